@@ -29,6 +29,9 @@ _SHARE = 0.1
 _LEAST_TURN_RAD, _LEAST_DISTANCE_M = 1e-3, 1e-3
 # Least duration of the parts before and after the clock was set, and least step (s).
 _LEAST_PART_S, _LEAST_JUMP_S = 10.0, 0.5
+# Where the clock was set, a step of odometry's stamps exceeds the usual one at least this many
+# times, by the jump to this share, and a split there is at least this share of the best one's gain.
+_LEAP, _LEAP_SHARE, _MUCH_OF_IT = 1.5, 0.2, 0.5
 # Least share of the largest possible number of movements that an offset must compare.
 _COVERED = 0.5
 # Largest ratio of the squared errors at another offset to those near the expected one or of others'
@@ -41,28 +44,58 @@ _UNRELATED, _MUCH_MOVEMENT = 0.5, 10.0
 _AT_ONCE = 1_000_000
 
 
-def best_split(
-    costs: Iterable[FloatArray], times_s: FloatArray, least_s: float
-) -> tuple[int, float, IntArray, float]:
-    """Split a series with times (N,) into two parts of a least duration, each with its own of K
-    alternatives, whose costs (K, N) come in blocks.
+@dataclass(frozen=True, eq=False)
+class Splits:
+    """A series split in two at each of its times, each part with its best alternative."""
 
-    Returns the last index of the first part, the cost, the alternatives of both (2,), and the cost
-    of the best one without a split.
-    """
-    columns, first, whole = np.arange(len(times_s)), 0, np.inf
-    least, best = np.full((2, len(times_s)), np.inf), np.zeros((2, len(times_s)), dtype=np.int64)
-    for block in costs:
-        before = np.cumsum(block, axis=1)
-        for side, total in enumerate((before, before[:, -1:] - before)):
-            own = np.argmin(total, axis=0)
-            best[side] = np.where(total[own, columns] < least[side], first + own, best[side])
-            least[side] = np.minimum(total[own, columns], least[side])
-        first, whole = first + len(block), min(whole, float(before[:, -1].min()))
-    parted = least.sum(axis=0)
-    parted[np.minimum(times_s - times_s[0], times_s[-1] - times_s) < least_s] = np.inf
-    at = int(np.argmin(parted))
-    return at, float(parted[at]), best[:, at], whole
+    times_s: FloatArray  # (N,) the last of the first part
+    costs: FloatArray  # (N,) of both parts, infinite where one is too short
+    alternatives: IntArray  # (2, N)
+    whole: float  # Cost of the best alternative without a split
+
+    @classmethod
+    def of(cls, costs: Iterable[FloatArray], times_s: FloatArray, least_s: float) -> Splits:
+        """The splits into parts of a least duration, given the costs (K, N) of K alternatives in
+        blocks.
+        """
+        columns, first, whole = np.arange(len(times_s)), 0, np.inf
+        least, best = np.full((2, len(times_s)), np.inf), np.zeros((2, len(times_s)), np.int64)
+        for block in costs:
+            before = np.cumsum(block, axis=1)
+            for side, total in enumerate((before, before[:, -1:] - before)):
+                own = np.argmin(total, axis=0)
+                best[side] = np.where(total[own, columns] < least[side], first + own, best[side])
+                least[side] = np.minimum(total[own, columns], least[side])
+            first, whole = first + len(block), min(whole, float(before[:, -1].min()))
+        both = least.sum(axis=0)
+        both[np.minimum(times_s - times_s[0], times_s[-1] - times_s) < least_s] = np.inf
+        return cls(times_s, both, best, whole)
+
+    def jump_s(self, offsets_s: FloatArray, odometry_s: FloatArray) -> float:
+        """Time of the best split, on the ground truth's clock, if the alternatives are offsets.
+
+        Movements show its time to some seconds, as long as the robot drives straight ahead. It is
+        exact where the stamps of odometry leap by the difference of the offsets, if a split there
+        explains much, too.
+        """
+        at = int(np.argmin(self.costs))
+        before_s, after_s = offsets_s[self.alternatives[:, at]].tolist()
+        steps_s = np.diff(odometry_s)
+        usual_s = float(np.median(steps_s))
+        leaps = np.flatnonzero(steps_s > _LEAP * usual_s)
+        # One of the two offsets, at least, is right.
+        times_s = np.concatenate(
+            [odometry_s[leaps] + 0.5 * usual_s - before_s,
+             odometry_s[leaps + 1] - 0.5 * usual_s - after_s]
+        )  # fmt: skip
+        last = np.clip(np.searchsorted(self.times_s, times_s) - 1, 0, len(self.times_s) - 1)
+        jumps_s = np.diff(offsets_s[self.alternatives[:, last]], axis=0)[0]
+        apart_s = np.abs(jumps_s - np.tile(steps_s[leaps] - usual_s, 2))
+        most = self.whole - _MUCH_OF_IT * (self.whole - self.costs[at])
+        good = (apart_s <= usual_s + _LEAP_SHARE * np.abs(jumps_s)) & (self.costs[last] <= most)
+        if not np.any(good):
+            return float(self.times_s[at])
+        return float(times_s[good][np.argmin(self.costs[last][good])])
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,8 +167,13 @@ class OffsetSearch:
             return around_s
         return float(_STEP_S * steps[best])
 
-    def set_at_s(self, part: PlanarPoses, largest_drift: float) -> float | None:
-        """Time at which the clock was set by more than a refinement finds, within a part."""
+    def set_at_s(
+        self, part: PlanarPoses, odometry_s: FloatArray, largest_drift: float
+    ) -> float | None:
+        """Time at which the clock was set by more than a refinement finds, within a part.
+
+        `odometry_s`: stamps of odometry.
+        """
         compared = self._compared([part])
         if compared is None or compared.unrelated < _MUCH_MOVEMENT:
             return None
@@ -145,8 +183,10 @@ class OffsetSearch:
         blocks = compared.single_errors(steps)
         costs = (np.minimum(block, compared.unrelated) for block in blocks)
         times_s = np.asarray(_STEP_S * (compared.at + compared.own.first))
-        at, cost, offsets, whole = best_split(costs, times_s, _LEAST_PART_S)
-        if cost > _MUCH_BETTER * whole or _STEP_S * np.ptp(offsets) < _LEAST_JUMP_S:
+        splits = Splits.of(costs, times_s, _LEAST_PART_S)
+        at = int(np.argmin(splits.costs))
+        cost, offsets = splits.costs[at], splits.alternatives[:, at]
+        if cost > _MUCH_BETTER * splits.whole or _STEP_S * np.ptp(offsets) < _LEAST_JUMP_S:
             return None
         # A clock that drifts has the mean offsets of both parts at their middles.
         drifts = np.array([1.6, 2.0, 2.4]) * np.diff(offsets) / np.ptp(compared.at)
@@ -155,7 +195,7 @@ class OffsetSearch:
             for block in compared.drifting(drift).single_errors(between):
                 if np.minimum(block, compared.unrelated).sum(axis=1).min() < cost:
                     return None
-        return float(times_s[at])
+        return splits.jump_s(np.asarray(_STEP_S * steps), odometry_s)
 
     def best_near(
         self, part: PlanarPoses, around_s: float, largest_drift: float

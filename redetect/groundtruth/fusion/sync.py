@@ -24,7 +24,7 @@ from redetect.array_types import FloatArray
 from redetect.groundtruth.errors import GroundTruthError
 from redetect.groundtruth.fusion import stream_errors
 from redetect.groundtruth.fusion.clock import ClockModel, ClockSegment, ClockStatus, on_one_line
-from redetect.groundtruth.fusion.coarse_offset import NEAR_S, OffsetSearch, best_split
+from redetect.groundtruth.fusion.coarse_offset import NEAR_S, OffsetSearch, Splits
 from redetect.groundtruth.fusion.fuse import maximum_likelihood_noise, variance_inflation
 from redetect.groundtruth.fusion.movement import MovementProblem, movement_problem
 from redetect.groundtruth.fusion.resets import continuous_odometry
@@ -119,7 +119,7 @@ def synchronise(
         "--largest-drift)"
     )
     found: list[ClockSegment] = []
-    parts, set_at_s = _parted_where_set(parts, search, settings.largest_drift)
+    parts, set_at_s = _parted_where_set(parts, search, odometry.times_s, settings.largest_drift)
     for part in parts:
         around_s = search.offset_s([part], common_s)
         own = PlanarPoses(odometry.times_s - around_s, odometry.poses)
@@ -142,12 +142,12 @@ def synchronise(
 
 
 def _parted_where_set(
-    parts: list[PlanarPoses], search: OffsetSearch, largest_drift: float
+    parts: list[PlanarPoses], search: OffsetSearch, odometry_s: FloatArray, largest_drift: float
 ) -> tuple[list[PlanarPoses], list[float]]:
     """The parts of the ground truth, split where the clock was set by far, and the times beside."""
     found, times_s = [], []
     for part in parts:
-        at_s = search.set_at_s(part, largest_drift)
+        at_s = search.set_at_s(part, odometry_s, largest_drift)
         which = [part.times_s < at_s, part.times_s >= at_s] if at_s is not None else [slice(None)]
         halves = [part.only(one) for one in which]
         if len(halves) == 2:
@@ -186,7 +186,7 @@ def _segment(
         note = f"its turns show no offset with a drift within {bounds.largest_drift:g} "
         return [_undetermined(segment, turned, note + "(--largest-drift)")]
     # If the clock was set in between, the parts have clocks of their own.
-    place = _jump(best, bounds) if jumps_left > 0 else None
+    place = _jump(best, odometry.times_s, bounds) if jumps_left > 0 else None
     if place is not None:
         parts = []
         for which in (segment.times_s < place, segment.times_s >= place):
@@ -399,7 +399,7 @@ def _smoothed(odometry: PlanarPoses) -> PlanarPoses:
     return PlanarPoses(begin_s + means[:, 0], means[:, 1:])
 
 
-def _jump(fit: ClockFit, bounds: SyncSettings) -> float | None:
+def _jump(fit: ClockFit, odometry_s: FloatArray, bounds: SyncSettings) -> float | None:
     """Time at which the clock was set, on the ground truth's clock; None if it was not.
 
     The parts before and after a time have the best of many offsets, without drift; a jump is found
@@ -408,10 +408,10 @@ def _jump(fit: ClockFit, bounds: SyncSettings) -> float | None:
     offsets = fit.clock[0] + max(float(fit.sigmas[0]), _JUMP_SPACING_S) * _JUMP_OFFSETS
     offsets = offsets[np.abs(offsets) <= bounds.largest_offset_s]
     squared = np.array([fit.squared(np.array([offset, 0.0])) for offset in offsets])
-    times_s = fit.problem_at(fit.clock).measured_s
-    at, cost, *_ = best_split([squared], times_s, _LEAST_PART_S)
-    gain = float(np.sum(fit.squared(fit.clock))) - cost
-    return float(times_s[at]) if gain >= _JUMP_GAIN else None
+    splits = Splits.of([squared], fit.problem_at(fit.clock).measured_s, _LEAST_PART_S)
+    if not float(np.sum(fit.squared(fit.clock)) - np.min(splits.costs)) >= _JUMP_GAIN:
+        return None
+    return splits.jump_s(offsets, odometry_s)
 
 
 def _differ(parts: list[ClockSegment]) -> bool:

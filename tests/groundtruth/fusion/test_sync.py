@@ -194,9 +194,33 @@ def test_a_clock_set_within_a_segment_is_marked_and_bounded(jump_s: float) -> No
     clocks = Clocks(offset_s=-0.1, drift=0.0, jump_at_s=25.0, jump_s=jump_s)
     found = synchronise(*simulate(clocks, seed=5))
     assert [segment.status for segment in found] == ["jump", "jump"]
-    assert abs(found[0].to_s - 25.0) < 1.5
+    # Odometry's stamps show it: to a sample, or to the spacing of offsets beyond a second.
+    within_s = 0.041 if jump_s < 1.0 else 0.15
+    assert abs(found[0].to_s - 25.0) < within_s
+    assert abs(found[1].from_s - 25.0) < within_s
     assert abs(found[0].offset_s + 0.1) < 0.02
     assert abs(found[1].offset_s + 0.1 - jump_s) < 0.02
+
+
+def test_where_a_clock_was_set_on_a_straight_path_is_seen_from_the_stamps() -> None:
+    """Headings do not change for eight seconds around it: only a step of odometry's times does."""
+    clocks = Clocks(offset_s=0.0, drift=0.0)
+    odometry, truth = simulate(clocks, seed=5)
+
+    def with_straight(poses: PlanarPoses) -> PlanarPoses:
+        """The path with a pause of turning from 22 s to 30 s."""
+        before, after = poses.only(poses.times_s <= 22.0), poses.only(poses.times_s > 22.0)
+        between = np.arange(before.times_s[-1], 30.0, np.diff(poses.times_s[:2])[0])[1:]
+        still = PlanarPoses(between, np.tile(before.poses[-1], (len(between), 1)))
+        return joined([before, still, PlanarPoses(after.times_s + 8.0, after.poses)])
+
+    odometry, truth = with_straight(odometry), with_straight(truth)
+    set_back = PlanarPoses(odometry.times_s + 0.3 * (odometry.times_s > 28.0), odometry.poses)
+    found = synchronise(set_back, truth)
+    assert [segment.status for segment in found] == ["jump", "jump"]
+    assert found[0].to_s <= 28.0 + 0.04
+    assert found[1].from_s >= 28.0 - 0.04
+    assert abs(found[1].offset_s - found[0].offset_s - 0.3) < 0.02
 
 
 @pytest.mark.long
