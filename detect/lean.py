@@ -95,8 +95,10 @@ def detect_tilted(
     return found, usual
 
 
-def leaning_as(images: Sequence[GreyImage], camera: Camera) -> Camera:
-    """The camera with the lean that the verticals show in most of some images.
+def leaning_as(
+    images: Sequence[GreyImage], camera: Camera, otherwise: Tilt | None = None
+) -> Camera:
+    """The camera with the lean that the verticals show in most of some images, or `otherwise`.
 
     Discs look larger or smaller to a camera that leans.
     """
@@ -108,7 +110,7 @@ def leaning_as(images: Sequence[GreyImage], camera: Camera) -> Camera:
         if tilt is not None and np.diag(tilt.covariance).max() < _SURE_RAD**2
     ]
     if not known or 2 * len(known) < len(images):
-        return camera
+        return camera if otherwise is None else leaning_camera(camera, otherwise)
     pitch, roll = np.median(known, axis=0).tolist()
     small = math.hypot(pitch, roll) < _LEAST_LEAN_RAD
     return camera if small else leaning_camera(camera, (pitch, roll))

@@ -21,6 +21,7 @@ from detect.projection import leaning_camera, level_rotation
 from detect.run_tilt import COMMON_RAD, FrameTilts, tilt_of_run
 from detect.settings import LEAST_FRAMES
 from redetect.array_types import FloatArray
+from redetect.messages import counted
 
 #: Changes of the height at which outlines of discs are evaluated, relative to the calibrated one.
 HEIGHT_STEPS = (-0.06, 0.0, 0.06)
@@ -53,7 +54,10 @@ class Mounting:
             f"{sigmas[1]:.2f} (roll) from its calibration, by the verticals of {self.frames} frames"
         )
         if math.isnan(self.raised_m):
-            why = "too few discs of that radius to estimate it"
+            why = (
+                f"{counted(self.frames_with_discs, 'frame')} with the outlines of discs of that "
+                f"radius: expected {LEAST_FRAMES}"
+            )
             if self.frames_with_discs >= LEAST_FRAMES:
                 why = "no height explains the outlines of the discs: is their radius right?"
             return [lean, f"its height is unchanged: {why}"]

@@ -49,7 +49,7 @@ def perform(options: Level) -> int:
 def _mounting(run: Run, camera: Camera, radius_m: float) -> tuple[Mounting, list[str]]:
     """The mounting of a run's camera, compared with the given one, and why frames failed."""
     height_m = float(camera.centre[2])
-    plan = FramePlan(camera, LineSettings(), CircleSettings(radius_m=radius_m), levelling="none")
+    plan = FramePlan(camera, LineSettings(), CircleSettings(radius_m=radius_m), levelling="frame")
     tilts, relative_pitch_rad, failures = [], [], list[str]()
     pitch_weights = camera_pitch_weights(camera)
     with progress_bar("verticals and outlines", run.frames.expected) as advance:

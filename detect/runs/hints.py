@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 
-from camera import Camera
 from detect.errors import DetectError, FrameError
-from detect.projection import leaning_camera
 from detect.runs.plan import Job, Priors, RunSummary
 from detect.settings import UNREFINED, CircleSettings
 from detect.sources.grey_images import read_image
 from detect.sources.interface import Run, spread_frames
-from redetect.array_types import ByteArray, GreyImage
+from redetect.array_types import ByteArray
 from redetect.messages import counted
 
 #: Approximate number of images from which the radius of the discs is estimated.
@@ -37,14 +35,6 @@ def some_images(run: Run, count: int = _RADIUS_IMAGES) -> Iterator[ByteArray]:
     for frame in spread_frames(run.frames, count):
         with suppress(FrameError):
             yield read_image(frame, run.camera)
-
-
-def _leaning(images: Sequence[GreyImage], camera: Camera, summary: RunSummary) -> Camera:
-    """The camera with the lean of the run, or that of the images."""
-    from detect.lean import leaning_as
-
-    lean = summary.lean
-    return leaning_as(images, camera) if lean is None else leaning_camera(camera, lean)
 
 
 def hints(job: Job, summary: RunSummary) -> Iterator[str]:
@@ -96,10 +86,13 @@ def hints(job: Job, summary: RunSummary) -> Iterator[str]:
         on_discs = list(_hints_on_discs(run, settings, summary))
     yield from on_discs
     if not on_discs and found["discs"] >= processed >= _FEWEST_FRAMES:
+        from detect.lean import leaning_as
         from detect.radius import ratio_of_radii
 
         images = list(some_images(run, _COMPARED_IMAGES))
-        ratio = ratio_of_radii(images, _leaning(images, camera, summary), settings)
+        # The lean of the search, which is partly by outlines, would hide a wrong height.
+        leaning = leaning_as(images, camera, otherwise=summary.lean)
+        ratio = ratio_of_radii(images, leaning, settings)
         if ratio is not None and abs(math.log(ratio)) > _OTHER_HEIGHT:
             yield (
                 f"the discs look {ratio:.2f} times as large as with a radius of "
@@ -112,13 +105,14 @@ def hints(job: Job, summary: RunSummary) -> Iterator[str]:
 def _hints_on_discs(run: Run, settings: CircleSettings, summary: RunSummary) -> Iterator[str]:
     """Why a run has few discs per frame; nothing if no other settings find more."""
     from detect.explanation import why_none
+    from detect.lean import leaning_as
     from detect.radius import find_radius
 
     images, number = list(some_images(run)), summary.found["discs"]
     processed = summary.frames - summary.failed
     if not images:  # by chance, all of these failed
         return
-    camera = _leaning(images, run.camera, summary)
+    camera = leaning_as(images, run.camera, otherwise=summary.lean)
     in_images = f"in {len(images)} of the images"
     frames = counted(processed, "frame")
     discs = f"{counted(number, 'disc')} of radius {settings.radius_m:g} m in {frames}. "

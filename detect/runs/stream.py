@@ -121,11 +121,14 @@ def with_initial_tilt(run: ImageRun, plan: FramePlan, pool: WorkerPool) -> Frame
 
     rows = rows_by(None)
     mean, usual_rad = tilt_of_some(camera, rows)
+    if mean is not None and (lean := lean_of_search(mean, rows, rows_by)) is not None:
+        # Discs that are found without the lean show less of it.
+        plan, usual_rad = replace(plan, lean=lean), max(usual_rad, math.hypot(*lean) / math.sqrt(2))
     known = mean is not None or usual_rad > circles.tilt_sigma_rad
     if known and circles.tilt_sigma_deg is None and plan.levelling != "run":
         circles = replace(circles, tilt_sigma_deg=round(math.degrees(usual_rad), 2))
         plan = replace(plan, circles=circles)
-    return plan if mean is None else replace(plan, lean=lean_of_search(mean, rows, rows_by))
+    return plan
 
 
 class RunFiles:

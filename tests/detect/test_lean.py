@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 import redetect as rd
 from camera import Camera, read_camera, write_camera
+from camera.model_checks import checked_pose
 from detect.circles import CircleDetections
 from detect.cli import main
 from detect.lean import lean_of_image
@@ -174,6 +175,28 @@ def test_discs_are_searched_with_all_of_a_lean_that_only_they_show(
     searched = re.search(r"pitch (-?[0-9.]+), roll (-?[0-9.]+)", capsys.readouterr().out)
     assert searched is not None
     np.testing.assert_allclose([float(x) for x in searched.groups()], lean_deg, atol=0.3)
+    # Positions, which are not levelled, state at least that lean.
+    settings = read_settings(tmp_path / "run" / "detected.circles.log.json").circles
+    assert settings.tilt_sigma_deg is not None
+    assert settings.tilt_sigma_deg > 0.85 * np.linalg.norm(lean_deg) / np.sqrt(2.0)
+
+
+@pytest.mark.parametrize(("height", "lean_deg"), [(1.0, 2.3), (1.15, -2.3)])
+def test_a_wrong_height_is_seen_whatever_the_lean(
+    project_root: Path, tmp_path: Path, capsys: Captured, height: float, lean_deg: float
+) -> None:
+    run = project_root / "images" / "e"
+    leaning = wrong_by(read_camera(run / "e.cam"), (lean_deg, 0.0))
+    pose = np.array(leaning.robot_from_camera)
+    pose[2, 3] *= height
+    write_camera(
+        replace(leaning, robot_from_camera=checked_pose("sensor2World", pose)), tmp_path / "w.cam"
+    )
+    assert main(["all", str(run), "--camera", str(tmp_path / "w.cam"), "-o", str(tmp_path)]) == 0
+    said = capsys.readouterr()
+    assert ("the discs look 1.15 times as large" in said.err) == (height > 1.0)
+    # The camera may have turned without the robot, which moves it by height times lean.
+    assert ("all discs are 7 cm off" in said.out) == (height == 1.0)
 
 
 def test_on_a_bare_floor_discs_level_the_run(

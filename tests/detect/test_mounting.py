@@ -20,7 +20,7 @@ from camera.model import PARAMETERS
 from camera.model_checks import checked_pose
 from camera.uncertainty import covariance_of, with_covariance
 from detect.levelling import common_covariance
-from detect.projection import image_positions, level_positions
+from detect.projection import image_positions, leaning_camera, level_positions
 from detect.run_mounting import HEIGHT_STEPS, Mounting, mounting_of_run, remounted
 from detect.run_tilt import FrameTilts
 from detect.settings import LEAST_FRAMES
@@ -76,7 +76,7 @@ def test_without_discs_the_height_stays() -> None:
 
     assert found is not None
     assert math.isnan(found.raised_m)
-    assert "height is unchanged" in found.sentences()[1]
+    assert "height is unchanged: 19 frames with the outlines of discs" in found.sentences()[1]
 
 
 @pytest.mark.parametrize("by_height", [0.0, -1.0])
@@ -176,6 +176,21 @@ def test_the_demos_camera_comes_back(project_root: Path, tmp_path: Path, capsys:
     unmoved = replace(found, robot_from_camera=true.robot_from_camera, covariance=true.covariance)
     assert unmoved == true
     assert main(command) == 1  # nothing is overwritten unasked
+
+
+def test_discs_are_searched_as_the_camera_leans(
+    project_root: Path, tmp_path: Path, capsys: Captured
+) -> None:
+    """By a calibration that is wrong by six degrees, a quarter of the frames show no discs."""
+    run = project_root / "images" / "e"
+    lean = (float(np.radians(-6.0)), 0.0)
+    write_camera(leaning_camera(read_camera(run / "e.cam"), lean), tmp_path / "wrong.cam")
+    words = ["level", str(run), "--camera", str(tmp_path / "wrong.cam")]
+    assert main([*words, "-o", str(tmp_path / "level.cam")]) == 0
+    said = re.search(r"height is (\S+) .* by the discs of (\d+) frames", capsys.readouterr().out)
+    assert said is not None
+    assert abs(float(said[1])) < 1.0
+    assert int(said[2]) > 70
 
 
 @pytest.mark.long
