@@ -43,12 +43,8 @@ def invert(a_from_b: ArrayLike) -> FloatArray:
 def between(world_from_a: ArrayLike, world_from_b: ArrayLike) -> FloatArray:
     """(..., 3) poses a_from_b of two poses in one world; the heading is wrapped."""
     a, b = np.asarray(world_from_a, dtype=np.float64), np.asarray(world_from_b, dtype=np.float64)
-    # The difference is rotated, not each pose: far from the origin this keeps more digits.
-    apart = b - a
-    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-    x = c * apart[..., 0] + s * apart[..., 1]
-    y = -s * apart[..., 0] + c * apart[..., 1]
-    return np.stack([x, y, wrap_angle(apart[..., 2])], axis=-1)
+    theta = wrap_angle(b[..., 2:] - a[..., 2:])
+    return np.concatenate([apply_inverse(a, b[..., :2]), theta], axis=-1)
 
 
 def pose_differences(poses: FloatArray, others: FloatArray) -> FloatArray:
@@ -90,6 +86,17 @@ def apply(a_from_b: ArrayLike, points: ArrayLike) -> FloatArray:
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     x = a[..., 0] + c * p[..., 0] - s * p[..., 1]
     y = a[..., 1] + s * p[..., 0] + c * p[..., 1]
+    return np.stack([x, y], axis=-1)
+
+
+def apply_inverse(a_from_b: ArrayLike, points: ArrayLike) -> FloatArray:
+    """(..., 2) points of frame a transformed to frame b by (..., 3) poses, broadcast."""
+    a = np.asarray(a_from_b, dtype=np.float64)
+    # Differences are rotated, not points: far from the origin this keeps more digits.
+    apart = np.asarray(points, dtype=np.float64) - a[..., :2]
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = c * apart[..., 0] + s * apart[..., 1]
+    y = -s * apart[..., 0] + c * apart[..., 1]
     return np.stack([x, y], axis=-1)
 
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from redetect.array_types import FloatArray
 from redetect.bounds import Bounded, NotNegative, Positive
-from redetect.plane import apply, between, rotation, with_heading
+from redetect.plane import apply, apply_inverse, between, rotation, with_heading
 from redetect.slam.errors import SlamError
 
 #: Typical height of the camera above the floor (m).
@@ -100,11 +100,7 @@ def disc_in_robot(pose: ArrayLike, disc_xy: ArrayLike) -> FloatArray:
 
     Takes `pose` (..., 3) of the robot and `disc_xy` (..., 2), both in the map; returns (..., 2).
     """
-    robot = np.asarray(pose, dtype=np.float64)
-    offset = np.asarray(disc_xy, dtype=np.float64) - robot[..., :2]
-    cos, sin = np.cos(robot[..., 2]), np.sin(robot[..., 2])
-    x, y = offset[..., 0], offset[..., 1]
-    return np.stack([cos * x + sin * y, -sin * x + cos * y], axis=-1)
+    return apply_inverse(pose, disc_xy)
 
 
 def disc_jacobians(pose: ArrayLike, disc_xy: ArrayLike) -> tuple[FloatArray, FloatArray]:
