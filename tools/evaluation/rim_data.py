@@ -38,6 +38,7 @@ from detect.settings import CircleSettings
 from lut import cached_vote_table
 from redetect.array_types import BoolArray, ByteArray, Float32Array, FloatArray
 from redetect.landmarks import read_frames
+from redetect.plane import rotation
 from tools.evaluation.disturbances import DISTURBANCES, LOOK_ALIKES, disturbed, replaced, with_disc
 from tools.evaluation.disturbed import BLURRED, BORDER, FloorScene, render_scene
 from tools.simulator.pixels import noisy_image, subpixel_grid
@@ -277,9 +278,7 @@ def _photographed(
 ) -> FloatArray:
     """Grey values of a floor that is covered with a photograph, again and again."""
     angle, length = rng.uniform(0.0, 2.0 * np.pi), rng.uniform(*_FLOOR_M)
-    turned = np.nan_to_num(floor_xy) @ np.array(
-        [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    )
+    turned = np.nan_to_num(floor_xy) @ rotation(angle)
     height, width = photograph.shape
     at = np.asarray(np.clip(turned, -50.0, 50.0) * (width / length) + 60.0 * width, np.float32)
     # Mirrored, so that there are no seams.
@@ -398,8 +397,7 @@ def render_disc_board(
     fine = 3
     pixels = subpixel_grid(camera, fine, fine)
     floor = camera.floor_from_pixel(pixels)
-    turn = rng.uniform(-np.pi, np.pi)
-    matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    matrix = rotation(rng.uniform(-np.pi, np.pi))
     at = np.nan_to_num(floor @ matrix, nan=1e6) + size / 2.0
     index = np.clip(np.rint(at / spacing), 0, [columns - 1, rows - 1])
     shifted = rng.random() < 0.4  # every second row by half of the spacing
