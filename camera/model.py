@@ -246,8 +246,7 @@ class Camera:
 
     def project_floor(self, floor_xy: ArrayLike) -> FloatArray:
         """(..., 2) pixels of (..., 2) points on the floor (robot X, Y in metres)."""
-        xy = np.asarray(floor_xy, dtype=np.float64)
-        return self.project_robot(np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1))
+        return self.project_robot(points_on_floor(floor_xy))
 
     def directions_robot(self, pixels: ArrayLike) -> FloatArray:
         """(..., 3) directions, in the robot frame and not normalised, that (..., 2) pixels see."""
@@ -306,11 +305,15 @@ class Camera:
         return self._floor_jacobian(self.floor_from_pixel(pixels), self.rotation.T)
 
     def _floor_jacobian(self, floor_xy: ArrayLike, camera_from_robot: FloatArray) -> FloatArray:
-        xy = np.asarray(floor_xy, dtype=np.float64)
-        point = np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)
-        in_camera = (point - self.centre) @ camera_from_robot.T
+        in_camera = (points_on_floor(floor_xy) - self.centre) @ camera_from_robot.T
         pixels_per_metre = self.project_jacobian(in_camera) @ camera_from_robot[:, :2]
         return inverse_2x2(pixels_per_metre)
+
+
+def points_on_floor(floor_xy: ArrayLike) -> FloatArray:
+    """(..., 3) points of the robot frame at (..., 2) places X, Y on the floor (m)."""
+    xy = np.asarray(floor_xy, dtype=np.float64)
+    return np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)
 
 
 def normalised_points(points_camera: ArrayLike) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from camera.calibration.model import COUNT, project_points
-from camera.model import PARAMETERS, Camera, Pose
+from camera.model import PARAMETERS, Camera, Pose, points_on_floor
 from camera.model_checks import checked_pose
 from camera.rotations import cross_matrices
 from redetect.array_types import FloatArray
@@ -101,7 +101,7 @@ def floor_by_parameters(camera: Camera, floor_xy: FloatArray) -> FloatArray:
     (N, 2, 20) float64
         Of the position assigned to the same pixel.
     """
-    offset = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - camera.centre
+    offset = points_on_floor(floor_xy) - camera.centre
     in_camera = offset @ camera.camera_from_robot.T
     _, by_intrinsics, by_point = project_points(intrinsics_of(camera), in_camera)
     by_place = by_point @ camera.camera_from_robot

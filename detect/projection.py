@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from camera import Camera
+from camera.model import points_on_floor
 from camera.model_checks import checked_pose
 from camera.rotations import rotation_of
 from detect.settings import USUAL_TILT_DEG, CircleSettings
@@ -38,8 +39,7 @@ def image_positions(
     `levelled_by` are pitch and roll (rad) by which the positions were levelled, and the camera is
     `raised_m` higher than calibrated.
     """
-    xy = np.asarray(floor_xy, dtype=np.float64)
-    points = np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)
+    points = points_on_floor(floor_xy)
     if levelled_by is not None:
         # The rotation levels measured directions; its transpose undoes that.
         points = points @ level_rotation(levelled_by)
@@ -54,10 +54,8 @@ def level_positions(
     Positions (..., 2) were computed without the tilt; pitch and roll (..., 2) (rad) are given once
     for all or broadcast against them. NaN where the levelled ray does not meet the floor.
     """
-    xy = np.asarray(floor_xy, dtype=np.float64)
     turn = level_rotation(levelled_by)
-    points = np.concatenate([xy, np.zeros_like(xy[..., :1])], axis=-1)
-    rays = (turn @ (points - camera.centre)[..., None])[..., 0]
+    rays = (turn @ (points_on_floor(floor_xy) - camera.centre)[..., None])[..., 0]
     centre = turn @ (camera.centre + np.array([0.0, 0.0, raised_m]))
     down = np.where(rays[..., 2:] < 0.0, rays[..., 2:], np.nan)
     return np.asarray(centre[..., :2] - centre[..., 2:] / down * rays[..., :2])

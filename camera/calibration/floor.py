@@ -17,7 +17,7 @@ from camera.calibration.calibrate import largest_rms_px
 from camera.calibration.model import COUNT
 from camera.calibration.start import best_poses, board_poses
 from camera.errors import CalibrationError
-from camera.model import Camera
+from camera.model import Camera, points_on_floor
 from camera.rotations import cross_matrices
 from camera.uncertainty import covariance_of, intrinsics_of, with_covariance, with_pose
 from redetect.array_types import FloatArray
@@ -60,7 +60,7 @@ def place_on_floor(
 
     Takes `pixels` (N, 2), `floor_xy` (N, 2), and the radius of circles there, 0 for points.
     """
-    floor = np.column_stack([floor_xy, np.zeros(len(floor_xy))])
+    floor = points_on_floor(floor_xy)
     _check(pixels, floor, (camera.width, camera.height))
     points = Points(floor, pixels, np.zeros(len(floor), np.int64), camera.width, camera.height)
     start = board_poses(intrinsics_of(camera), points)[0]

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from camera import Camera
 from camera.calibration.model import COUNT
+from camera.model import points_on_floor
 from camera.rotations import cross_matrices, rotation_of
 from camera.uncertainty import covariance_of, with_covariance, with_pose
 from redetect.array_types import FloatArray
@@ -29,7 +30,7 @@ def rows_through_mounting(
     """
     turn = mounting[:, :3] @ np.linalg.inv(camera.rotation)
     centre = mounting[:, 3]
-    ray = (np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - camera.centre) @ turn.T
+    ray = (points_on_floor(floor_xy) - camera.centre) @ turn.T
     slope, by_ray = _on_floor(ray, centre[2])
     across = np.broadcast_to(np.eye(2), (len(ray), 2, 2))
     turning = -by_ray @ cross_matrices(ray)
@@ -61,7 +62,7 @@ def rows_as_recorded(
     `rows_through_mounting`.
     """
     unturn = np.linalg.inv(mounting[:, :3] @ np.linalg.inv(camera.rotation))
-    from_centre = np.column_stack([floor_xy, np.zeros(len(floor_xy))]) - mounting[:, 3]
+    from_centre = points_on_floor(floor_xy) - mounting[:, 3]
     height = float(camera.centre[2])
     slope, by_ray = _on_floor(from_centre @ unturn.T, height)
     by_robot = by_ray @ unturn
