@@ -377,9 +377,9 @@ def _with_jitter(measured: PlanarPoses, odometry: PlanarPoses, rounding: FloatAr
     covariances = measured.covariances
     if covariances is None:
         covariances = np.diag([0.0, 0.0, stream_errors.white_noise_sigmas(measured)[2] ** 2])
-    # Between two samples odometry's path is unknown by the sag of what it bends.
-    sag = np.sqrt(np.mean(np.square(np.diff(odometry.continuous, 2, axis=0)), axis=0)) / 8.0
-    variances = stream_errors.white_noise_sigmas(odometry) ** 2 + sag**2 + rounding**2
+    # Between two samples odometry's path may be off its chord by the sagitta of a parabola.
+    sagitta = np.sqrt(np.mean(np.square(np.diff(odometry.continuous, 2, axis=0)), axis=0)) / 8.0
+    variances = stream_errors.white_noise_sigmas(odometry) ** 2 + sagitta**2 + rounding**2
     own = np.tile(np.diag(variances), (len(measured), 1, 1))
     return PlanarPoses(measured.times_s, measured.poses, covariances + own)
 

@@ -124,9 +124,9 @@ def _covariance(pose: FloatArray, discs: FloatArray, targets: FloatArray) -> Flo
 
 
 def _drift(step_covariance: FloatArray, pose: FloatArray, discs: FloatArray) -> FloatArray:
-    """Covariance added by odometry along the way: all discs are moved, and rotated together.
+    """Covariance added by odometry along the path: all discs are moved, and rotated together.
 
-    Errors of steps are random, and systematic ones add up: discs are seen after half of the way on
+    Errors of steps are random, and systematic ones add up: discs are seen after half of the path on
     average.
     """
     sigmas = np.sqrt(np.diagonal(step_covariance, axis1=1, axis2=2)).sum(axis=0)
