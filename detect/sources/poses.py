@@ -43,7 +43,7 @@ DATASET_FROM_ROBOTICS: FloatArray = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0],
 _INDEFINITE = 1e-8  # of its largest
 _ROUNDING = 1e-12  # of the pose's own covariance: rounding errors
 # Variance of the rounding of a step's numbers, which files have with five decimals.
-_ROUNDED = 1e-10 / 12.0
+_DECIMALS, _ROUNDED = 5, 1e-10 / 12.0
 _UNIT = 1e-2  # Tolerance of the length of a trajectory's quaternions.
 # Times are written with six digits: the last image may seem to be later than the last pose.
 _END_SLACK_S = 1e-3
@@ -100,6 +100,20 @@ def step_between(prefix: str, before: TimedPose, after: TimedPose) -> Step:
     return Step(prefix, *pose.tolist(), *c[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]].tolist())
 
 
+def rounded(step: Step, reached: TimedPose, pose: TimedPose) -> tuple[Step, TimedPose]:
+    """A step with as many decimals as in files, and the pose that it leads to.
+
+    It begins where the steps before it lead to, so that their rounding does not add up.
+    """
+    rest = step_between(step.prefix, reached, pose)
+    left, backward, turn = (round(value, _DECIMALS) for value in (rest.dx, rest.dy, rest.dphi))
+    cos, sin = math.cos(reached.theta), math.sin(reached.theta)
+    x = reached.x - cos * backward - sin * left
+    y = reached.y - sin * backward + cos * left
+    after = replace(pose, x=x, y=y, theta=reached.theta + turn)
+    return replace(step, dx=left, dy=backward, dphi=turn), after
+
+
 def carried(
     covariance: FloatArray, before: TimedPose, after: TimedPose, share: float = 1.0
 ) -> FloatArray:
@@ -118,7 +132,8 @@ def pose_between(before: TimedPose, after: TimedPose, time_s: float) -> TimedPos
         before.x + share * (after.x - before.x),
         before.y + share * (after.y - before.y),
         before.theta + share * float(wrap_angle(after.theta - before.theta)),
-        carried(before.covariance, before, after, share) + share * grown,
+        carried(before.covariance, before, after, share)
+        + share * carried(grown, before, after, share - 1.0),
         before.unknown + share * (after.unknown - before.unknown),
     )
 
@@ -300,6 +315,7 @@ class FramesAlongPoses(Frames):
         with closing(iter(self._source)) as images, closing(self._stream.read()) as read:
             poses = PosesOverTime(read, self._stream)
             last: TimedPose | None = None
+            reached: TimedPose | None = None
             missed_s = math.nan
             for image in images:
                 pose = None if image.time_s is None else poses.at(image.time_s)
@@ -307,12 +323,17 @@ class FramesAlongPoses(Frames):
                     self.left_out += 1
                     missed_s = missed_s if image.time_s is None else image.time_s
                     continue
-                if last is not None:
+                after = pose
+                if last is not None and reached is not None:
                     step = step_between(image.step.prefix, last, pose)
-                    image = replace(image, step=replace(step, **_LOST) if poses.jumped else step)
+                    if poses.jumped:
+                        step = replace(step, **_LOST)
+                    else:
+                        step, after = rounded(step, reached, pose)
+                    image = replace(image, step=step)
                 poses.jumped = poses.jumps
                 yield image
-                last = pose
+                last, reached = pose, after
             if self.left_out and last is None:
                 raise DetectError(
                     f"{self._stream.name}: no pose at the time of any image; the first pose is of "

@@ -266,12 +266,19 @@ def _ids(words: list[bytes]) -> tuple[int, ...]:
     return tuple(map(int, words))
 
 
-def format_record(record: Record) -> str:
+def format_record(record: Record, *, exact: bool = False) -> str:
     """Format a record as a row of a file, without line end.
 
     Poses of steps have 5 decimals and their covariances 12, as C's ``%8.5f`` and ``%.12f``;
     landmarks have 6 significant digits, as C's ``%g``; corners of markers, in pixels, 4 decimals.
+    If `exact`, steps and discs have as many digits as are needed to read the same numbers.
     """
+    if exact and isinstance(record, Step):
+        return " ".join(["STEP", record.prefix, *map(repr, numbers_of_step(record))])
+    if exact and isinstance(record, CircleLandmark):
+        return " ".join(
+            ["LANDMARK_C", *map(repr, numbers_of_circle(record)), *map(str, record.ids)]
+        )
     if isinstance(record, Step):
         return _STEP_ROW % (record.prefix, *numbers_of_step(record))
     if isinstance(record, MarkerLandmark):
@@ -297,25 +304,27 @@ def format_head(head: str) -> bytes:
     return b"".join(_encode(f"# {line}".rstrip() + "\n") for line in lines)
 
 
-def format_frame(frame: Frame) -> bytes:
+def format_frame(frame: Frame, *, exact: bool = False) -> bytes:
     """The rows of a frame in a file: its STEP, its levelling and its landmarks."""
-    rows = [format_record(record) for record in (frame.step, *frame.landmarks)]
+    rows = [format_record(record, exact=exact) for record in (frame.step, *frame.landmarks)]
     if frame.levelled_by is not None:
         rows.insert(1, format_levelling(frame.levelled_by))
     return _encode("".join(f"{row}\n" for row in rows))
 
 
 def write_frames(
-    path: FilePath, frames: Iterable[Frame], *, head: str = "", overwrite: bool = False
-) -> None:
+    path: FilePath, frames: Iterable[Frame], *, head: str = "", overwrite: bool = False,
+    exact: bool = False,
+) -> None:  # fmt: skip
     """Write frames to a landmark file, whole or not at all, with a text as comments at its head.
 
-    They are written as they are iterated. OutputExistsError if it exists, unless `overwrite`.
+    They are written as they are iterated; `exact` as for `format_record`. OutputExistsError if it
+    exists, unless `overwrite`.
     """
     with write_whole(path, overwrite=overwrite) as stream:
         stream.write(format_head(head))
         for frame in frames:
-            stream.write(format_frame(frame))
+            stream.write(format_frame(frame, exact=exact))
 
 
 def write_rows(path: FilePath, rows: Iterable[Row], *, overwrite: bool = False) -> None:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from redetect.array_types import FloatArray
 from redetect.landmarks import CircleLandmark, Frame, Step, wrap_angle
 from redetect.plane import between, rotation
+from redetect.slam.cli import main
 from redetect.slam.errors import SlamError
 from redetect.slam.formats.g2o import (
     RunGraph,
@@ -263,3 +264,14 @@ def test_identifiers_that_have_no_vertex_are_refused(tmp_path: Path) -> None:
     with pytest.raises(SlamError, match=f"disc {number}: expected an identifier of at most"):
         write_g2o(tmp_path / "a.g2o", graph)
     assert not (tmp_path / "a.g2o").exists()
+
+
+def test_an_imported_graph_keeps_small_numbers(tmp_path: Path) -> None:
+    """Fast frames have steps of micrometres, with covariances that 12 decimals make zero."""
+    graph, run = tmp_path / "fast.g2o", tmp_path / "fast.circles"
+    step = "EDGE_SE2 0 1 0.0012345678 0 4e-06 4e12 0 0 4e12 0 4e12\n"
+    graph.write_text(POSES + step + SIGHT)
+    assert main(["import", str(graph), "-o", str(run)]) == 0
+    found, expected = read_recording(run), read_g2o(graph).recording
+    np.testing.assert_array_equal(found.steps, expected.steps)
+    np.testing.assert_array_equal(found.step_covariance, expected.step_covariance)

@@ -40,6 +40,8 @@ _NEIGHBOURS, _GROSS = 7, 6.0
 _LEAST_GROSS = 0.12
 # Covariances are raised if the jitter exceeds their deviations by more than this factor.
 _BELIEVED = 1.5
+# Ratio of eigenvalues below which a covariance is singular.
+_SINGULAR = 1e-9
 #: Its name in the file beside a stream.
 COMMON = "common_covariance"
 # A common covariance below this share of the poses' own is left in them.
@@ -141,7 +143,7 @@ def with_usable_covariances(name: str, poses: PlanarPoses) -> tuple[PlanarPoses,
     if poses.covariances is None:
         raise GroundTruthError(f"{name}: no covariances: expected t, x, y, theta and 9 more")
     symmetric = 0.5 * (poses.covariances + np.swapaxes(poses.covariances, 1, 2))
-    smallest = np.linalg.eigvalsh(symmetric)[:, 0]
+    smallest, _, largest = np.linalg.eigvalsh(symmetric).T
     worst = float(smallest.min(initial=0.0))
     # Three entries of a row may each be off by the rounding.
     if worst < -3.0 * RAWSEEDS_ROUNDING:
@@ -149,7 +151,10 @@ def with_usable_covariances(name: str, poses: PlanarPoses) -> tuple[PlanarPoses,
             f"{name}: pose {int(np.argmin(smallest)) + 1} has a covariance with eigenvalue "
             f"{worst:.3g}: expected none below what rounding to six decimals makes of 0"
         )
-    weak = smallest <= RAWSEEDS_ROUNDING * 0.1
+    # Precise poses, with more decimals, are not singular.
+    units = symmetric / (2.0 * RAWSEEDS_ROUNDING)
+    rounded = np.all(np.abs(units - np.rint(units)) < 1e-3, axis=(1, 2))
+    weak = smallest <= np.where(rounded, RAWSEEDS_ROUNDING * 0.1, _SINGULAR * largest)
     added = RAWSEEDS_ROUNDING + np.maximum(0.0, -smallest[weak])
     symmetric[weak] += np.eye(3) * added[:, None, None]
     return PlanarPoses(poses.times_s, poses.poses, symmetric), int(np.count_nonzero(weak))

@@ -55,6 +55,9 @@ _LEAST_DETERMINED = 0.1
 # The same for the drift, which is assumed to be 0 if it is not determined.
 _DETERMINED_DRIFT = 0.025
 _NEAR_S = 0.1
+# Number of other offsets within the bounds, farther than so many deviations, and by how much their
+# deviance must be higher: in straight drives it is by up to 30 (empirical).
+_OTHERS, _OTHER_SIGMAS, _DISTINCT = 41, 4.0, 40.0
 _ANOTHER_START_S = 0.2
 _MOST_JUMPS = 3
 _JUMP_OFFSETS = np.arange(-40, 41)
@@ -181,10 +184,13 @@ def _segment(
     if len(measured) < _FEWEST_SAMPLES:
         return [_undetermined(segment, turned, _NO_ODOMETRY)]
     jittered = _with_jitter(measured, own, stream_errors.rounding_sigmas(odometry.only(near)))
-    best = _fit_of_segment(own, jittered, start, bounds, measured.covariances is not None)
-    if best is None:
-        note = f"its turns show no offset with a drift within {bounds.largest_drift:g} "
-        return [_undetermined(segment, turned, note + "(--largest-drift)")]
+    fits = _fits_of_segment(own, jittered, start, bounds, measured.covariances is not None)
+    no_offset = (
+        f"its turns show no offset with a drift within {bounds.largest_drift:g} (--largest-drift)"
+    )
+    if fits is None:
+        return [_undetermined(segment, turned, no_offset)]
+    by_headings, best = fits
     # If the clock was set in between, the parts have clocks of their own.
     place = _jump(best, odometry.times_s, bounds) if jumps_left > 0 else None
     if place is not None:
@@ -196,6 +202,8 @@ def _segment(
             parts += _segment(odometry, part, bounds, moved, jumps_left - 1)
         if _differ(parts):
             return [_set_near(place, part) for part in parts]
+    if not by_headings.is_distinct(bounds.largest_offset_s):
+        return [_undetermined(segment, turned, no_offset)]
     reference_s = float(np.mean(measured.times_s))
     offset_s, drift = best.clock.tolist()
     times_s = measured.times_s + offset_s + drift * (measured.times_s - reference_s)
@@ -221,14 +229,14 @@ def _segment(
     ]
 
 
-def _fit_of_segment(
+def _fits_of_segment(
     odometry: PlanarPoses,
     measured: PlanarPoses,
     start: FloatArray,
     bounds: SyncSettings,
     whole: bool,
-) -> ClockFit | None:
-    """The more certain of the clocks by headings alone and by whole poses, if these are known.
+) -> tuple[ClockFit, ClockFit] | None:
+    """The clock by headings alone, and the more certain of this and that by whole poses, if known.
 
     None if turns do not determine the offset.
     """
@@ -241,14 +249,14 @@ def _fit_of_segment(
         return None
     driven = np.sum(np.hypot(*np.diff(odometry.poses[:, :2], axis=0).T))
     if not whole or driven < _LEAST_WAY_M:
-        return by_headings
+        return by_headings, by_headings
     # Headings of a robot that hardly turns are a poor start.
     far = abs(start[0] - by_headings.clock[0]) > _ANOTHER_START_S
     starts = [by_headings.clock, start] if far else [by_headings.clock]
     fits = [_most_likely_clock(odometry, measured, at, bounds) for at in starts]
     maxima = [fit for fit in fits if fit is not None]
     by_poses = min(maxima, key=lambda fit: fit.deviance, default=by_headings)
-    return min((by_headings, by_poses), key=lambda fit: fit.uncertainty(measured))
+    return by_headings, min((by_headings, by_poses), key=lambda fit: fit.uncertainty(measured))
 
 
 def _set_near(time_s: float, clock: ClockSegment) -> ClockSegment:
@@ -270,6 +278,20 @@ class ClockFit(NamedTuple):
     def deviance(self) -> float:
         """Minus twice the log-likelihood."""
         return self.problem_at(self.clock).innovations(self.noise).deviance
+
+    def is_distinct(self, largest_offset_s: float) -> bool:
+        """Whether no other offset within a bound is nearly as likely.
+
+        Where nothing shows the offset, jitter makes the likelihood rough: it has maxima, with a
+        curvature, anywhere.
+        """
+        offsets = np.linspace(-largest_offset_s, largest_offset_s, _OTHERS)
+        near = max(_OTHER_SIGMAS * float(self.sigmas[0]), _NEAR_S)
+        limit = self.deviance + _DISTINCT
+        return all(
+            self._replace(clock=np.array([offset, self.clock[1]])).deviance > limit
+            for offset in offsets[np.abs(offsets - self.clock[0]) > near].tolist()
+        )
 
     def squared(self, clock: FloatArray) -> FloatArray:
         """(M,) squared normalised errors of the measured poses with another clock, gated."""

@@ -174,7 +174,9 @@ def _write_run(command: Import, run: Recording, what: str, *notes: str) -> None:
     settings = ", ".join(f"{name}: {getattr(command, name)}" for name in _flags_used(command))
     head = [_made_by(command.file), *([settings] if settings else []), *notes]
     frames = frames_of_discs(run)
-    write_frames(command.output, frames, head="\n".join(head), overwrite=command.force)
+    # Five decimals are too few for the steps of fast frames, and twelve for their covariances.
+    text = "\n".join(head)
+    write_frames(command.output, frames, head=text, overwrite=command.force, exact=True)
     print("; ".join([f"{command.output}: {len(run)} steps, {len(run.circles)} {what}", *notes]))
 
 

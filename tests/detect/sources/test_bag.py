@@ -135,7 +135,7 @@ def test_steps_and_covariances_of_odometry_come_back(tmp_path: Path) -> None:
     c = STEP_COVARIANCE
     for frame, (forward, left, phi) in zip(frames[1:], moves, strict=True):
         s = frame.step
-        assert (s.dx, s.dy, s.dphi) == pytest.approx((left, -forward, phi), abs=1e-9)
+        assert (s.dx, s.dy, s.dphi) == pytest.approx((left, -forward, phi), abs=1e-5)
         # X left, Y backward: cov(X, Y) = -cov(left, forward), and so on.
         expected = (c[1, 1], -c[0, 1], c[0, 0], c[1, 2], -c[0, 2], c[2, 2])
         assert (s.cxx, s.cxy, s.cyy, s.cxphi, s.cyphi, s.cphiphi) == pytest.approx(
@@ -254,8 +254,8 @@ def test_images_between_poses_and_beyond_them(tmp_path: Path) -> None:
     assert run.frames.left_out == 3
     assert "pose of" in run.frames.why_left_out
     half_turn = np.pi - 3.1
-    assert frames[1].step.dphi == pytest.approx(half_turn)  # the shorter way round
-    assert frames[1].step.dy == pytest.approx(-0.2 * np.cos(3.1))
+    assert frames[1].step.dphi == pytest.approx(half_turn, abs=1e-5)  # the shorter way round
+    assert frames[1].step.dy == pytest.approx(-0.2 * np.cos(3.1), abs=1e-5)
 
 
 def test_odometry_that_is_reset_is_lost_there(tmp_path: Path) -> None:

@@ -18,7 +18,9 @@ from detect.sources.image_files import RunFrames
 from detect.sources.opening import open_source
 from detect.sources.poses import (
     TimedPose,
+    carried,
     pose_between,
+    rounded,
     step_between,
     tick_poses,
     tum_poses,
@@ -218,7 +220,8 @@ def test_velocities_give_steps_with_covariances(timed_run: Path, tmp_path: Path)
     assert (ahead.cyy, ahead.cphiphi) == pytest.approx((0.5 * 0.02**2, of_turn))
     assert ahead.cxx == pytest.approx(0.5 * 0.02**2 + of_turn * 0.3**2 / 3.0)
     assert ahead.cxphi == pytest.approx(of_turn * 0.15)
-    assert (arc.dx, arc.dy) == pytest.approx((0.5 * (1 - math.cos(0.4)), -0.5 * math.sin(0.4)))
+    end = 0.5 * (1 - math.cos(0.4)), -0.5 * math.sin(0.4)
+    assert (arc.dx, arc.dy) == pytest.approx(end, abs=1e-5)
     assert arc.dphi == pytest.approx(0.4)
     assert arc.cphiphi == 0.0  # not stated
 
@@ -438,3 +441,28 @@ def test_malformed_velocities(timed_run: Path, tmp_path: Path, content: str, tol
     path.write_text(content)
     with pytest.raises(DetectError, match=told):
         list(open_source(timed_run, None, SourceOptions(odometry=str(path))).frames)
+
+
+@given(st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_parts_of_a_movement_have_valid_covariances(one: float, other: float) -> None:
+    """Images are often faster than odometry, whose heading's errors move its end aside."""
+    grown = np.array([[1e-4, 0.0, 0.0], [0.0, 0.09 / 3.0 + 1e-9, 0.15], [0.0, 0.15, 1.0]]) * 1e-3
+    before, after = TimedPose(0.0, 0.0, 0.0, 0.0), TimedPose(1.0, 0.3, 0.0, 0.0, grown)
+    first, second = (pose_between(before, after, t) for t in sorted((one, other)))
+    added = second.covariance - carried(first.covariance, first, second)
+    assert np.linalg.eigvalsh(added)[0] > -1e-12
+    rest = after.covariance - carried(second.covariance, second, after)
+    assert np.linalg.eigvalsh(rest)[0] > -1e-12
+
+
+def test_rounding_of_steps_does_not_add_up() -> None:
+    """Of a slow robot, or fast images, it would be the same in each step."""
+    start = last = reached = TimedPose(0.0, 0.0, 0.0, 0.0)
+    sums = np.zeros(3)
+    for k in range(1, 1001):
+        pose = TimedPose(k / 30.0, k * 1.2345e-3, 0.0, k * 3.3e-6)
+        step, reached = rounded(step_between("s", last, pose), reached, pose)
+        assert [step.dx, step.dy, step.dphi] == [round(v, 5) for v in (step.dx, step.dy, step.dphi)]
+        sums, last = sums + np.array([step.dx, step.dy, step.dphi]), pose
+    assert sums[2] == pytest.approx(last.theta - start.theta, abs=1e-5)
+    assert [reached.x, reached.y] == pytest.approx([last.x, last.y], abs=1e-5)

@@ -14,6 +14,7 @@ from redetect.groundtruth.fusion.stream_errors import (
     read_common_covariance,
     with_common,
     with_jitter_covered,
+    with_usable_covariances,
     without_common,
 )
 from redetect.groundtruth.settings import FuseSettings
@@ -89,3 +90,15 @@ def test_common_errors_are_taken_out_and_put_back(tmp_path: Path) -> None:
     stream.with_suffix(".json").write_text(json.dumps({"common_covariance": common.tolist()}))
     assert read_common_covariance(stream) == pytest.approx(common)
     assert read_common_covariance(tmp_path / "laser.csv.gz") == pytest.approx(common)
+
+
+def test_precise_poses_are_not_singular() -> None:
+    """Covariances of a tenth of a millimetre, as of motion capture, stay as they are."""
+    count = 5
+    covariances = np.tile(1e-8 * np.eye(3) + 1e-9, (count, 1, 1))
+    poses = PlanarPoses(np.arange(count) * 0.1, np.zeros((count, 3)), covariances)
+    usable, repaired = with_usable_covariances("laser", poses)
+    assert repaired == 0
+    np.testing.assert_array_equal(usable.covariances, covariances)
+    rounded = PlanarPoses(poses.times_s, poses.poses, np.round(covariances, 6))
+    assert with_usable_covariances("laser", rounded)[1] == count

@@ -516,3 +516,20 @@ def test_a_first_row_from_before_the_clock_was_set_costs_nothing() -> None:
     (found,) = synchronise(joined([early, odometry]), truth)
     assert found.status == "ok"
     assert abs(found.offset_s - 0.237) < 0.01
+
+
+def test_straight_drives_do_not_show_an_offset() -> None:
+    """White noise of odometry and poses alone gives the likelihood maxima with a curvature."""
+    times = np.arange(0.0, 70.0, 0.02)
+    for seed in range(4):
+        generator = np.random.default_rng(seed)
+        length = 0.01 + generator.normal(size=len(times)) * 0.001
+        heading = np.cumsum(generator.normal(size=len(times)) * 0.001)
+        steps = length[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
+        odometry = PlanarPoses(times + 0.18, np.column_stack([np.cumsum(steps, axis=0), heading]))
+        at = np.arange(0.1, 60.0, 0.05)
+        poses = np.column_stack([0.5 * at, np.zeros((len(at), 2))])
+        poses += generator.normal(size=poses.shape) * 0.01
+        covariances = np.tile(1e-4 * np.eye(3), (len(at), 1, 1))
+        (found,) = synchronise(odometry, PlanarPoses(at, poses, covariances))
+        assert not found.is_determined
