@@ -54,6 +54,8 @@ LASTING_SHARE, LASTING = 0.5, 0.9
 OUTLIER_SHARE, OUTLIER_RAD = 0.02, math.radians(2.0)
 #: Share of frames with a momentary tilt (a wheel on a sill or a cable), and its size (rad).
 JUMP_SHARE, JUMP_RAD = 0.03, math.radians(2.0)
+#: A lean is certain beyond this number of standard deviations; displacement of discs that matters.
+_CERTAIN_SIGMAS, _LEAST_OFF_M = 3.0, 0.02
 _LEAST_RAD = math.radians(0.02)  #: Least standard deviation of a frame's tilt (rad).
 
 
@@ -95,16 +97,22 @@ class RunTilt:
         """Root mean square of pitch and roll: the standard deviation of an unknown tilt."""
         return math.sqrt(np.mean(self.tilt**2 + self.variance))
 
-    def sentence(self) -> str:
-        """A sentence on the constant lean."""
+    def sentence(self, height_m: float) -> str:
+        """A sentence on the constant lean, and what it may mean for discs of a camera this high."""
         pitch, roll = (
             f"{math.degrees(lean):.2f} +- {math.degrees(sigma):.2f}"
             for lean, sigma in zip(self.lean, self.lean_sigma)
         )
         by = "" if self.by_verticals else ", by the outlines of discs"
+        # Levelling turns about the robot's origin on the floor.
+        off_m = height_m * math.hypot(*self.lean)
+        certain = math.hypot(*self.lean) > _CERTAIN_SIGMAS * math.hypot(*self.lean_sigma)
+        if_alone = (
+            f" (if the camera alone leans, not the robot, discs are {100.0 * off_m:.0f} cm off)"
+        )
         return (
             f"the camera leans {pitch} (pitch) and {roll} degrees (roll) from its calibration{by}: "
-            "levelled by it"
+            f"levelled by it{if_alone if certain and off_m > _LEAST_OFF_M else ''}"
         )
 
 

@@ -6,7 +6,6 @@ import math
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from detect.errors import DetectError, WorkerError
 from detect.options import All, Circles, DetectorFlags, DiscIdOptions, Lines, Markers
@@ -31,13 +30,6 @@ from detect.sources.opening import demand_recording, open_run, open_source
 from detect.terminal import progress_bar, report_failures
 from redetect.landmarks.files import read_head
 from redetect.messages import counted
-
-if TYPE_CHECKING:
-    from detect.run_tilt import RunTilt
-
-#: A lean of the camera is certain beyond so many standard deviations, and worth a word if it may
-#: move all discs by this.
-_CERTAIN_SIGMAS, _LEAST_OFF_M = 3.0, 0.02
 
 
 def perform(command: DetectorFlags) -> int:
@@ -182,15 +174,15 @@ def _workers(command: DetectorFlags, job: Job) -> Workers:
 
 def _print_results(job: Job, summary: RunSummary) -> None:
     found, outputs, tilt = summary.found, job.outputs, summary.tilt
+    camera, circles = job.plan.camera, job.plan.circles
     frames = counted(summary.frames, "frame")
     if "lines" in outputs:
         print(f"{outputs['lines']}: {counted(found['lines'], 'line')} in {frames}")
     if "tilt" in outputs and tilt is not None:
         place = frames_tilt_place(outputs["tilt"])
         print(f"{place}: the separate tilts of {counted(found['tilts'], 'frame')}")
-        print(f"{outputs['tilt']}: {tilt.sentence()}")
-        if "circles" in outputs and job.plan.camera is not None:
-            print(_about_the_floor(tilt, float(job.plan.camera.centre[2])), end="")
+        height_m = float(camera.centre[2]) if camera and "circles" in outputs else 0.0
+        print(f"{outputs['tilt']}: {tilt.sentence(height_m)}")
     elif "tilt" in outputs:
         others = _other_frames(job.plan, summary)
         print(f"{outputs['tilt']}: the tilt of {counted(found['tilts'], 'frame')}{others}")
@@ -206,7 +198,6 @@ def _print_results(job: Job, summary: RunSummary) -> None:
             "positions are not levelled: pitch and roll are assumed unknown within "
             f"{summary.unlevelled_deg:g} degrees, as some frames show (detect all levels them)"
         )
-    camera, circles = job.plan.camera, job.plan.circles
     if circles and circles.refine and camera and camera.covariance is None:
         print(
             "the calibration has no covariance: its error is assumed to be "
@@ -219,18 +210,6 @@ def _print_results(job: Job, summary: RunSummary) -> None:
     if summary.rejected:
         causes = ", ".join(f"{cause} {count}" for cause, count in sorted(summary.rejected.items()))
         print(f"rejected: {causes}")
-
-
-def _about_the_floor(tilt: RunTilt, height_m: float) -> str:
-    """How far discs are off if the camera alone leans, not the robot; nothing if it hardly does."""
-    lean_rad = math.hypot(*tilt.lean)
-    off_m = height_m * lean_rad
-    if lean_rad < _CERTAIN_SIGMAS * math.hypot(*tilt.lean_sigma) or off_m < _LEAST_OFF_M:
-        return ""
-    return (
-        "that is taken for the robot's lean, about its origin on the floor: if only the camera has "
-        f"turned on its mount, all discs are {100.0 * off_m:.0f} cm off (`camera floor`)\n"
-    )
 
 
 def _other_frames(plan: FramePlan, summary: RunSummary) -> str:

@@ -214,7 +214,7 @@ def test_without_verticals_the_outlines_level(seed: int, stated: bool, with_vert
         np.zeros(2) if stated else None,
     )
     assert not run.by_verticals
-    assert "outlines" in run.sentence()
+    assert "outlines" in run.sentence(1.4)
     assert np.all(np.abs(run.lean - 0.2 * LEAN) < 2.5 * run.lean_sigma)
     assert np.all(np.std(run.tilt - true, axis=0) < 0.6 * np.std(true, axis=0))
     assert np.all(np.mean((run.tilt - true) ** 2 / run.variance, axis=0) < 2.5)

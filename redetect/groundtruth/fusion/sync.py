@@ -55,8 +55,8 @@ _LEAST_DETERMINED = 0.1
 # The same for the drift, which is assumed to be 0 if it is not determined.
 _DETERMINED_DRIFT = 0.025
 _NEAR_S = 0.1
-# Number of other offsets within the bounds, farther than so many deviations, and by how much their
-# deviance must be higher: in straight drives it is by up to 30 (empirical).
+# Number of other offsets within the bounds, their least distance (deviations), and by how much
+# their deviance must be higher: in straight drives it is by up to 30 (empirical).
 _OTHERS, _OTHER_SIGMAS, _DISTINCT = 41, 4.0, 40.0
 _ANOTHER_START_S = 0.2
 _MOST_JUMPS = 3
