@@ -32,6 +32,7 @@ from detect.discs.rim import (
 )
 from detect.discs.rim_network import (
     HOPELESS,
+    PRESCREENED,
     Networks,
     network_inputs,
     network_log_odds,
@@ -126,7 +127,7 @@ def judge(
     grey, scale = sparse_profiles(image, camera_numbers, candidates.floor_xy, nominal)
     contrast = _contrast(grey, sign, least_step)
     seen = network_inputs(grey, scale, sign)
-    odds = network_log_odds(*seen, score[:, None], networks.prescreening)
+    odds = network_log_odds(*seen, score[:, None], networks.prescreening, PRESCREENED)
     left = np.flatnonzero(contrast > 0.0)
     outcome[left], value[left] = Outcome.PRESCREENING, odds[left]
     left = left[odds[left] >= _LEAST_PRESCREENING]

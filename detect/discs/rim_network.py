@@ -36,6 +36,8 @@ OTHERS, SCALES = 2, 2
 _NOISE = 9.0
 #: Mean log-odds below and above which further networks are skipped.
 HOPELESS, CERTAIN = -3.0, 3.0
+#: The same in the prescreening, whose networks all pass nearly all discs.
+PRESCREENED = -0.6, 0.6
 
 _Weights = Float32Array
 
@@ -174,23 +176,32 @@ def _pool(values: _Weights, scales: _Weights) -> _Weights:
 
 @kernel()
 def network_log_odds(
-    inputs: _Weights, scales: _Weights, features: FloatArray, network: RimNetwork
-) -> FloatArray:
-    """(N,) log-odds that rims with (N, F) features are discs', the mean of the networks."""
+    inputs: _Weights, scales: _Weights, features: FloatArray, network: RimNetwork,
+    doubtful: tuple[float, float] = (HOPELESS, CERTAIN),
+) -> FloatArray:  # fmt: skip
+    """(N,) log-odds that rims with (N, F) features are discs', the mean of the networks.
+
+    Further networks see only those whose mean so far is within `doubtful`.
+    """
     samples, (members, units) = len(scales), network.dense_bias.shape
     odds = np.zeros(samples)
+    left = np.arange(samples)
     for n in range(members):
-        around = _convolve(inputs, network.around[n], network.around_bias[n], samples)
-        again = _convolve(around, network.again[n], network.again_bias[n], samples)
-        pooled = _pool(again, scales)
-        doubtful = 0
-        for sample in range(samples):
-            if not HOPELESS <= odds[sample] <= CERTAIN:
-                continue
+        if n > 0:
+            again = np.flatnonzero((odds[left] >= doubtful[0]) & (odds[left] <= doubtful[1]))
+            some = inputs.reshape(len(inputs), -1, len(left))[:, :, again]
+            inputs, left = some.reshape(len(inputs), -1), left[again]
+        if len(left) == 0:
+            break
+        around = _convolve(inputs, network.around[n], network.around_bias[n], len(left))
+        around = _convolve(around, network.again[n], network.again_bias[n], len(left))
+        pooled = _pool(around, scales[left])
+        for j in range(len(left)):
+            sample = left[j]
             dense = network.dense_bias[n].copy()
             for i in range(pooled.shape[1]):
                 for d in range(units):
-                    dense[d] += pooled[sample, i] * network.dense[n, i, d]
+                    dense[d] += pooled[j, i] * network.dense[n, i, d]
             value = np.float64(network.out_bias[n])
             for d in range(units):
                 value += max(dense[d], np.float32(0.0)) * network.out[n, d]
@@ -198,7 +209,4 @@ def network_log_odds(
                 value += features[sample, f] * network.out[n, units + f]
             # The mean so far.
             odds[sample] += (value - odds[sample]) / (n + 1)
-            doubtful += HOPELESS <= odds[sample] <= CERTAIN
-        if doubtful == 0:
-            break
     return odds

@@ -22,6 +22,7 @@ from detect.sources.interface import Frames, RunFrame, Source
 from redetect.array_types import FloatArray
 from redetect.landmarks import Step, wrap_angle
 from redetect.landmarks.records import STEP_NUMBERS
+from redetect.plane import compose
 from redetect.storage.bounded import rows_of_numbers
 
 #: Limit of distances from the start (m), so that products of two remain finite.
@@ -107,11 +108,9 @@ def rounded(step: Step, reached: TimedPose, pose: TimedPose) -> tuple[Step, Time
     """
     rest = step_between(step.prefix, reached, pose)
     left, backward, turn = (round(value, _DECIMALS) for value in (rest.dx, rest.dy, rest.dphi))
-    cos, sin = math.cos(reached.theta), math.sin(reached.theta)
-    x = reached.x - cos * backward - sin * left
-    y = reached.y - sin * backward + cos * left
-    after = replace(pose, x=x, y=y, theta=reached.theta + turn)
-    return replace(step, dx=left, dy=backward, dphi=turn), after
+    start = reached.x, reached.y, reached.theta
+    x, y, theta = compose(start, (-backward, left, turn)).tolist()
+    return replace(step, dx=left, dy=backward, dphi=turn), replace(pose, x=x, y=y, theta=theta)
 
 
 def carried(
@@ -314,8 +313,7 @@ class FramesAlongPoses(Frames):
         self.left_out = 0
         with closing(iter(self._source)) as images, closing(self._stream.read()) as read:
             poses = PosesOverTime(read, self._stream)
-            last: TimedPose | None = None
-            reached: TimedPose | None = None
+            last: tuple[TimedPose, TimedPose] | None = None  # and the one to which its steps lead
             missed_s = math.nan
             for image in images:
                 pose = None if image.time_s is None else poses.at(image.time_s)
@@ -323,17 +321,17 @@ class FramesAlongPoses(Frames):
                     self.left_out += 1
                     missed_s = missed_s if image.time_s is None else image.time_s
                     continue
-                after = pose
-                if last is not None and reached is not None:
-                    step = step_between(image.step.prefix, last, pose)
+                reached = pose
+                if last is not None:
+                    step = step_between(image.step.prefix, last[0], pose)
                     if poses.jumped:
                         step = replace(step, **_LOST)
                     else:
-                        step, after = rounded(step, reached, pose)
+                        step, reached = rounded(step, last[1], pose)
                     image = replace(image, step=step)
                 poses.jumped = poses.jumps
                 yield image
-                last, reached = pose, after
+                last = pose, reached
             if self.left_out and last is None:
                 raise DetectError(
                     f"{self._stream.name}: no pose at the time of any image; the first pose is of "

@@ -39,7 +39,7 @@ FloatArray = NDArray[np.floating]
 
 _BATCH = 256
 #: Share of the discs that the prescreening may lose.
-_LOST_BY_PRESCREENING = 0.02
+_LOST_BY_PRESCREENING = 0.01
 _LONGEST_STEP, _RISING, _DECAY = 6e-3, 0.3, 0.02
 _MOMENTUM, _SQUARES = 0.9, 0.99
 #: A sample is never taken for certain.
@@ -71,7 +71,7 @@ class Shape(NamedTuple):
     epochs: int
 
 
-SHAPES = {"prescreening": Shape(12, 8, 1, 30), "classifier": Shape(16, 24, 4, 40)}
+SHAPES = {"prescreening": Shape(12, 8, 3, 30), "classifier": Shape(16, 24, 4, 40)}
 
 
 class Batch(NamedTuple):
@@ -311,7 +311,7 @@ def train_prescreening(sparse: Samples, used: NDArray[np.bool_], seed: int) -> R
     network = train(sparse, used, SHAPES["prescreening"], seed)
     discs = used & sparse.is_disc
     seen = _seen(sparse.grey[discs, 0], sparse.pixels_per_radius[discs, 0])
-    odds = network_log_odds(*seen, sparse.features[discs], network)
+    odds = network_log_odds(*seen, sparse.features[discs], network, (-np.inf, np.inf))
     least = np.quantile(odds, _LOST_BY_PRESCREENING).astype(np.float32)
     return network._replace(out_bias=network.out_bias - least)
 
