@@ -27,8 +27,9 @@ from redetect.messages import counted
 HEIGHT_STEPS = (-0.06, 0.0, 0.06)
 #: Relative standard deviation of a radius: of the edge of a blurred disc, and of the print.
 _RADIUS_SIGMA = 0.01
-#: Largest change of the height that the outlines show, and share of frames that mostly have discs.
-_MOST_RAISED, _FEW_DISCS = 0.6, 0.4
+#: Largest change of the height that the outlines show, its largest standard deviation (both
+#: relative to the height), and share of frames that mostly have discs.
+_MOST_RAISED, _MOST_SIGMA, _FEW_DISCS = 0.6, 0.05, 0.4
 _CORRELATED_FRAMES = 5.0  #: Number of neighbouring frames that see the same discs.
 #: Indices of the pose's parameters in a calibration's covariance (`camera.uncertainty`).
 _POSITION, _ROTATION = slice(COUNT, COUNT + 3), slice(COUNT + 3, PARAMETERS)
@@ -99,8 +100,9 @@ def mounting_of_run(
         if abs(share) < _MOST_RAISED:
             spread = 1.4826 * float(np.median(np.abs(same - off)))
             of_median = spread * math.sqrt(0.5 * math.pi * _CORRELATED_FRAMES / count)
-            raised_m = share * height_m
-            sigma_m = height_m * math.hypot(of_median / slope, COMMON_RAD / slope, _RADIUS_SIGMA)
+            sigma = math.hypot(of_median / slope, COMMON_RAD / slope, _RADIUS_SIGMA)
+            if sigma < _MOST_SIGMA:  # look-alikes contradict each other
+                raised_m, sigma_m = share * height_m, sigma * height_m
     frames = int(np.count_nonzero(verticals.known))
     return Mounting(run.lean, run.lean_sigma, raised_m, sigma_m, frames, frames_with_discs=count)
 

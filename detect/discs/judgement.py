@@ -31,8 +31,8 @@ from detect.discs.rim import (
     profiles,
 )
 from detect.discs.rim_network import (
-    HOPELESS,
-    PRESCREENED,
+    DOUBTFUL_CANDIDATE,
+    DOUBTFUL_RIM,
     Networks,
     network_inputs,
     network_log_odds,
@@ -119,7 +119,8 @@ def judge(
         """Profiles, features and log-odds of the rims of some candidates."""
         radial, features = profiles_at(rims["floor_xy"]), _features(rims, nominal, score[of])
         seen = network_inputs(pairs_of_steps(radial.grey), radial.pixels_per_radius, sign[of])
-        return radial, features, network_log_odds(*seen, features, networks.classifier)
+        odds = network_log_odds(*seen, features, networks.classifier, DOUBTFUL_RIM)
+        return radial, features, odds
 
     # Prescreening, of all candidates.
     count, sign, score = len(candidates.score), candidates.sign, candidates.score
@@ -127,7 +128,7 @@ def judge(
     grey, scale = sparse_profiles(image, camera_numbers, candidates.floor_xy, nominal)
     contrast = _contrast(grey, sign, least_step)
     seen = network_inputs(grey, scale, sign)
-    odds = network_log_odds(*seen, score[:, None], networks.prescreening, PRESCREENED)
+    odds = network_log_odds(*seen, score[:, None], networks.prescreening, DOUBTFUL_CANDIDATE)
     left = np.flatnonzero(contrast > 0.0)
     outcome[left], value[left] = Outcome.PRESCREENING, odds[left]
     left = left[odds[left] >= _LEAST_PRESCREENING]
@@ -143,7 +144,7 @@ def judge(
 
     radial, features, odds = classified(rims, left)
     # A rim is seen best from its own centre, but that may lead to another circle.
-    doubtful = np.flatnonzero((odds >= HOPELESS) & (odds < _CERTAIN))
+    doubtful = np.flatnonzero((odds >= DOUBTFUL_RIM[0]) & (odds < _CERTAIN))
     step = rims["step"][doubtful]
     again = follow_rims(image, camera_numbers, radial.where(doubtful), step)
     found = again["agreeing"] >= rims["agreeing"][doubtful] - _SLACK

@@ -34,10 +34,9 @@ WEIGHTS_FILE = Path(__file__).with_name("rim_network.npz")
 OTHERS, SCALES = 2, 2
 #: Added to the variance of the grey values, grey levels squared: less contrast than this is noise.
 _NOISE = 9.0
-#: Mean log-odds below and above which further networks are skipped.
-HOPELESS, CERTAIN = -3.0, 3.0
-#: The same in the prescreening, whose networks all pass nearly all discs.
-PRESCREENED = -0.6, 0.6
+#: Mean log-odds between which further networks are asked: in the prescreening, whose networks all
+#: pass nearly all discs, and about rims.
+DOUBTFUL_CANDIDATE, DOUBTFUL_RIM = (-0.6, 0.6), (-3.0, 3.0)
 
 _Weights = Float32Array
 
@@ -177,7 +176,7 @@ def _pool(values: _Weights, scales: _Weights) -> _Weights:
 @kernel()
 def network_log_odds(
     inputs: _Weights, scales: _Weights, features: FloatArray, network: RimNetwork,
-    doubtful: tuple[float, float] = (HOPELESS, CERTAIN),
+    doubtful: tuple[float, float],
 ) -> FloatArray:  # fmt: skip
     """(N,) log-odds that rims with (N, F) features are discs', the mean of the networks.
 

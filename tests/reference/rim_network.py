@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from detect.discs.rim_network import CERTAIN, HOPELESS, RimNetwork
+from detect.discs.rim_network import RimNetwork
 
 FloatArray = NDArray[np.floating]
 
@@ -24,12 +24,13 @@ def inputs_of(
 
 
 def log_odds_of(
-    inputs: FloatArray, scales: FloatArray, features: FloatArray, network: RimNetwork
-) -> float:
+    inputs: FloatArray, scales: FloatArray, features: FloatArray, network: RimNetwork,
+    doubtful: tuple[float, float],
+) -> float:  # fmt: skip
     """See `detect.discs.rim_network.network_log_odds`."""
     odds: list[float] = []
     for member in range(len(network.out)):
-        if odds and not HOPELESS <= np.mean(odds) <= CERTAIN:
+        if odds and not doubtful[0] <= np.mean(odds) <= doubtful[1]:
             break
         w = RimNetwork(*(array[member] for array in network))
         a = _relu(_convolved(inputs, w.around) + w.around_bias)

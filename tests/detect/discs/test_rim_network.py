@@ -8,7 +8,13 @@ from numpy.typing import NDArray
 
 from detect.discs.judgement import FEATURES
 from detect.discs.rim import DIRECTIONS, STEPS
-from detect.discs.rim_network import RimNetwork, network_inputs, network_log_odds, trained_networks
+from detect.discs.rim_network import (
+    DOUBTFUL_RIM,
+    RimNetwork,
+    network_inputs,
+    network_log_odds,
+    trained_networks,
+)
 from tests.reference import rim_network as reference
 
 FloatArray = NDArray[np.float64]
@@ -27,19 +33,23 @@ def some_profiles(seed: int) -> Profiles:
 def odds_of(profiles: list[Profiles], signs: list[float], network: RimNetwork) -> FloatArray:
     grey, scale, features = (np.array(each) for each in zip(*profiles, strict=True))
     inputs = network_inputs(grey.astype(np.float32), scale, np.array(signs))
-    return network_log_odds(*inputs, features, network)
+    return network_log_odds(*inputs, features, network, DOUBTFUL_RIM)
 
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_the_compiled_network_is_its_equation(seed: int, sign: float) -> None:
+@pytest.mark.parametrize("doubtful", [DOUBTFUL_RIM, (0.0, 0.0), (-100.0, 100.0)])
+def test_the_compiled_network_is_its_equation(
+    seed: int, sign: float, doubtful: tuple[float, float]
+) -> None:
     grey, scale, features = some_profiles(seed)
     inputs, scales = network_inputs(grey[None].astype(np.float32), scale[None], np.array([sign]))
     expected, expected_scales = reference.inputs_of(grey, scale, sign)
     np.testing.assert_allclose(inputs[:, 1:-1].T, expected, atol=2e-6)
     np.testing.assert_allclose(scales[0], expected_scales, atol=2e-6)
-    [found] = network_log_odds(inputs, scales, features[None], trained_networks().classifier)
-    odds = reference.log_odds_of(expected, expected_scales, features, trained_networks().classifier)
+    network = trained_networks().classifier
+    [found] = network_log_odds(inputs, scales, features[None], network, doubtful)
+    odds = reference.log_odds_of(expected, expected_scales, features, network, doubtful)
     assert found == pytest.approx(odds, abs=1e-4)
 
 

@@ -96,9 +96,9 @@ def test_precise_poses_are_not_singular() -> None:
     """Covariances of a tenth of a millimetre, as of motion capture, stay as they are."""
     count = 5
     covariances = np.tile(1e-8 * np.eye(3) + 1e-9, (count, 1, 1))
-    poses = PlanarPoses(np.arange(count) * 0.1, np.zeros((count, 3)), covariances)
+    poses = PlanarPoses(np.linspace(0.0, 0.4, count), np.zeros((count, 3)), covariances)
     usable, repaired = with_usable_covariances("laser", poses)
     assert repaired == 0
     np.testing.assert_array_equal(usable.covariances, covariances)
-    rounded = PlanarPoses(poses.times_s, poses.poses, np.round(covariances, 6))
+    rounded = PlanarPoses(poses.times_s, poses.poses, covariances.round(6))
     assert with_usable_covariances("laser", rounded)[1] == count

@@ -7,7 +7,13 @@ import pytest
 
 from detect.discs.judgement import DENSE_RADII
 from detect.discs.rim import DIRECTIONS, STEPS
-from detect.discs.rim_network import OTHERS, RimNetwork, network_inputs, network_log_odds
+from detect.discs.rim_network import (
+    DOUBTFUL_RIM,
+    OTHERS,
+    RimNetwork,
+    network_inputs,
+    network_log_odds,
+)
 from redetect.array_types import FloatArray
 from tests.reference import rim_network as reference
 from tools.evaluation import rim_network_training as training
@@ -32,7 +38,7 @@ def log_odds(network: RimNetwork, samples: Samples) -> FloatArray:
     sign = np.ones(len(samples.is_disc))
     scale = samples.pixels_per_radius[:, 0].astype(float)
     inputs = network_inputs(samples.grey[:, 0], scale, sign)
-    return network_log_odds(*inputs, samples.features, network)
+    return network_log_odds(*inputs, samples.features, network, DOUBTFUL_RIM)
 
 
 def test_what_is_trained_on_is_what_the_network_sees() -> None:
